@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phydict.runtime.reading import check_memory
+from phydict.runtime.memory import check_memory
 
 
 def _numbers(values) -> np.ndarray:

@@ -54,6 +54,7 @@ from phydict.prior import (
 )
 from phydict.prior.correction import TOLERANCE
 from phydict.reconstruction import Reconstruction, Reconstructor
+from phydict.runtime.memory import freed_memory_kept
 from phydict.runtime.own_code import is_own
 from phydict.runtime.precision import check_precision
 from phydict.runtime.profiling import Stopwatch
@@ -267,7 +268,8 @@ def reconstruct_by(method: Reconstructor, grid: Grid, xrays: Tensor, beam: ConeB
     continues beyond the voxels (`extended`) and binned; other arguments as those of `reconstruct`. Raises ValueError
     where X-rays, geometry and grid do not fit, and warns where the X-rays look inverted.
     """
-    with heard() as warnings, torch.autocast(xrays.device.type, enabled=False):
+    with heard() as warnings, torch.autocast(xrays.device.type, enabled=False), freed_memory_kept(
+            method.bytes_on(grid)):
         if isinstance(method, Region) and is_smaller_scene(beam, method.outer):
             method = method.base  # of a scene that is smaller than a chest
         check_fit(xrays, beam, grid, method.survey, display)

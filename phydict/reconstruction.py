@@ -17,8 +17,8 @@ from torch import Tensor
 
 from phydict.grid import Grid
 from phydict.runtime.files import atomic_write
+from phydict.runtime.memory import TooLittleMemory, check_memory
 from phydict.runtime.own_code import check_dataclass, is_own, own_code
-from phydict.runtime.reading import TooLittleMemory, check_memory
 from phydict.units import MU_WATER
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.carried import Carried
@@ -187,11 +187,15 @@ class Reconstructor(ABC):
         it is bound to those it has."""
         return self if self.grid is None else None
 
+    def bytes_on(self, grid: Grid) -> int:
+        """Bytes that a process holds during a reconstruction on a grid's voxels, at most."""
+        return PROCESS + 4 * self.volumes * math.prod(grid.shape)
+
     def check_voxels(self, grid: Grid, now: bool = False) -> None:
         """Raises TooLittleMemory where a reconstruction on a grid's voxels takes more memory than there is; now: than
         is free."""
-        check_memory(PROCESS + 4 * self.volumes * math.prod(grid.shape), f"a reconstruction on "
-                     f"{' x '.join(map(str, grid.shape))} voxels, {self.volumes} volumes of them at once,",
+        check_memory(self.bytes_on(grid), f"a reconstruction on {' x '.join(map(str, grid.shape))} voxels, "
+                     f"{self.volumes} volumes of them at once,",
                      "give fewer voxels, or a smaller box of them", now)
 
     def has_memory_for(self, grid: Grid) -> bool:

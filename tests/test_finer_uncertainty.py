@@ -16,7 +16,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import reconstructor
 from phydict.posterior import Refined, Unrolled
 from phydict.posterior.refined import ON_FINER
-from phydict.prior import load_correction, save_refiner, save_stage
+from phydict.prior import load_correction, local_unet, save_refiner, save_stage
 from phydict.prior.correction import CorrectionNetwork
 from phydict.prior.finer_uncertainty import INPUT_CHANNELS, FinerUncertainty, tissue_of_seen
 from phydict.prior.uncertainty import LEVELS, TISSUES
@@ -75,6 +75,14 @@ def test_odd_sizes_are_those_of_their_voxels_repeated_at_the_end():
     network, given = FinerUncertainty((4, 8)), seen(9, 8, 7)
     whole = network(pad(given, (0, 1, 0, 0, 0, 1), mode="replicate"))
     torch.testing.assert_close(network(given), whole[..., :9, :, :7])
+
+
+def test_slab_by_slab_it_is_that_of_the_whole(monkeypatch):
+    network, given = FinerUncertainty((4, 8, 12)), seen(32, 24, 20)
+    whole = network(given)
+    for planes in (2, 6, 10):
+        monkeypatch.setattr(local_unet, "SLAB_VOXELS", planes * 24 * 20)
+        torch.testing.assert_close(network(given), whole, atol=1e-6, rtol=1e-5)
 
 
 def test_intervals_on_finer_voxels_are_the_networks_where_it_learnt_on_these_and_nested():

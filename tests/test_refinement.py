@@ -22,7 +22,7 @@ from phydict.grid import Cube, Grid
 from phydict.methods import METHODS, corrections_of, reconstruct, reconstructor
 from phydict.posterior import ProximalCG, Refined, Refinement, Unrolled, refined
 from phydict.posterior.coarse_correction import coarse_correction
-from phydict.prior import DEFAULT_REFINER, correction, load_correction, save_prior, save_stage
+from phydict.prior import DEFAULT_REFINER, load_correction, local_unet, save_prior, save_stage
 from phydict.prior.correction import INPUTS, CorrectionNetwork
 from phydict.runtime.profiling import profiled
 from phydict.runtime.warning import Remark
@@ -52,7 +52,7 @@ def test_slab_by_slab_the_correction_is_that_of_the_whole(monkeypatch, shape):
     torch.nn.init.normal_(corrects.join.weight, std=0.3)
     whole = corrects(seen)
     for planes in (2, 6, 10):
-        monkeypatch.setattr(correction, "SLAB_VOXELS", planes * 24 * 20)
+        monkeypatch.setattr(local_unet, "SLAB_VOXELS", planes * 24 * 20)
         torch.testing.assert_close(corrects(seen), whole, atol=1e-6, rtol=1e-5)
 
 

@@ -29,11 +29,12 @@ from phydict.posterior import Sampler
 from phydict.reconstruction import Reconstruction, save_nifti
 from phydict.runtime.console import TRACEBACK, noted, sentence
 from phydict.runtime.files import atomic_directory, remove_leftovers
+from phydict.runtime.memory import TooLittleMemory
 from phydict.runtime.precision import instruction_set
 from phydict.runtime.profiling import peak_memory, profiled, reset_peak_memory
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.progress_log import log_progress
-from phydict.runtime.reading import TooLittleMemory, not_written
+from phydict.runtime.reading import not_written
 from phydict.runtime.seeds import case_seed
 from phydict.runtime.strict_json import strict_json
 

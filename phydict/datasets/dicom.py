@@ -21,7 +21,8 @@ from pydicom.multival import MultiValue
 from pydicom.pixels import apply_modality_lut, pixel_array
 
 from phydict.datasets.intensity import Intensity
-from phydict.runtime.reading import MOST_SQUEEZED, Unreadable, check_held, check_memory, one_line, reading, refusing
+from phydict.runtime.memory import check_memory
+from phydict.runtime.reading import MOST_SQUEEZED, Unreadable, check_held, one_line, reading, refusing
 from phydict.runtime.warning import warn
 
 VIEW_POSITIONS = {"PA": 0.0, "LL": 90.0, "AP": 180.0, "RL": -90.0}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from phydict.runtime.reading import check_memory
+from phydict.runtime.memory import check_memory
 
 ENDINGS = (".mhd", ".mha", ".nrrd")
 

@@ -6,7 +6,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from phydict.runtime.reading import MOST_SQUEEZED, check_held, check_memory
+from phydict.runtime.memory import check_memory
+from phydict.runtime.reading import MOST_SQUEEZED, check_held
 
 if TYPE_CHECKING:
     from nibabel.spatialimages import SpatialImage

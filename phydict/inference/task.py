@@ -38,10 +38,11 @@ from phydict.posterior import CascadePosterior, Refined, Sampler
 from phydict.prior import MedSynCheckpoint, PriorContract, find_prior, load_super_resolution
 from phydict.reconstruction import Reconstruction, Reconstructor
 from phydict.runtime.console import TRACEBACK, check_apart, check_writable, noted, sentence
+from phydict.runtime.memory import enough_memory
 from phydict.runtime.profiling import profiled, stage
 from phydict.runtime.progress import CaseProgress
 from phydict.runtime.progress_log import log_problem, log_progress
-from phydict.runtime.reading import enough_memory, name_of
+from phydict.runtime.reading import name_of
 from phydict.runtime.seeds import case_seed, check_seed
 from phydict.runtime.warning import Remark, warn
 from phydict.units import HUWindow

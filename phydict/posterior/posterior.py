@@ -22,11 +22,11 @@ from phydict.prior import AnyPrior, BoundRefiner, Refiner
 from phydict.prior.contract import bound, check_answer, precision_of
 from phydict.prior.uncertainty import LEVELS
 from phydict.reconstruction import Reconstruction, Reconstructor, check_projected_from
+from phydict.runtime.memory import check_memory
 from phydict.runtime.own_code import is_own
 from phydict.runtime.precision import check_precision
 from phydict.runtime.profiling import Stopwatch, stage
 from phydict.runtime.ranges import check_between, check_fields
-from phydict.runtime.reading import check_memory
 from phydict.runtime.warning import warn
 from phydict.units import MU_WATER, HUWindow
 from phydict.xray import Projector

@@ -13,17 +13,13 @@ from phydict.grid import Grid
 from phydict.prior.convolution import lay_out, silence, speed_up
 from phydict.prior.evidence_channels import EVIDENCE_CHANNELS
 from phydict.prior.finer_uncertainty import FinerUncertainty
-from phydict.prior.local_unet import PositionNorm, prolonged, unnormalised_unet
+from phydict.prior.local_unet import PositionNorm, prolonged, slab_by_slab, unnormalised_unet
 from phydict.prior.stage_file import header_start
 from phydict.runtime.precision import network_precision
 from phydict.units import HUWindow
 
 INPUTS = 1 + EVIDENCE_CHANNELS
 """The estimate and the evidence there."""
-
-SLAB_VOXELS = 2**22
-"""Voxels, up to those of whole planes, that the layers of full resolution see at once: more take memory and gain no
-time."""
 
 TOLERANCE = 0.01
 """A share of the spacing by which voxels may differ from those learnt on."""
@@ -86,23 +82,12 @@ class CorrectionNetwork(nn.Module):
         """The corrected estimate (B, 1, X, Y, Z) of an estimate and its evidence (B, INPUTS, X, Y, Z), in the prior's
         range, for any sizes."""
         padded = prolonged(seen, self.divisor).contiguous(memory_format=torch.channels_last_3d)
-        down, below, up = self.unet.model.children()
         x, y, z = seen.shape[2:]
-        lacking = self._lacking(up, below(down(padded)), padded)
+        lacking = slab_by_slab(self.unet, self._head, padded)
         return seen[:, :1] + lacking[..., :x, :y, :z].to(seen.dtype)
 
-    def _lacking(self, up: nn.Module, coarse: Tensor, padded: Tensor) -> Tensor:
-        """What the estimate lacks, by the layers of full resolution: the UNet's last, which knows one plane before and
-        one behind of its input (B, C, X / 2, Y / 2, Z / 2), and the head, which knows one more of both."""
-        planes = coarse.shape[2]
-        slab = max(SLAB_VOXELS // padded[0, 0, :2].numel(), 1)
-        slabs = []
-        for start in range(0, planes, slab):
-            stop = min(start + slab, planes)
-            first, last = max(start - 1, 0), min(stop + 2, planes)
-            h = torch.cat([self.norm(up(coarse[:, :, first:last])), padded[:, :, 2 * first:2 * last]], 1)
-            slabs.append(self.leave(silu(self.join(h)))[:, :, 2 * (start - first):2 * (stop - first)])
-        return torch.cat(slabs, 2)
+    def _head(self, found: Tensor, seen: Tensor) -> Tensor:
+        return self.leave(silu(self.join(torch.cat([self.norm(found), seen], 1))))
 
     @torch.no_grad()
     def corrected(self, z: Tensor, evidence: Tensor, precision: str = "auto") -> Tensor:

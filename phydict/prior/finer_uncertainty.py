@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn.functional import silu
 
 from phydict.prior.convolution import lay_out, speed_up
-from phydict.prior.local_unet import prolonged, unnormalised_unet
+from phydict.prior.local_unet import prolonged, slab_by_slab, unnormalised_unet
 from phydict.prior.uncertainty import LEVELS, LOG_SCALE, TISSUES, quantiles_of, steepness, tissue_of
 
 INPUT_CHANNELS = 4
@@ -48,10 +48,13 @@ class FinerUncertainty(nn.Module):
         z, before, width, lung = prolonged(seen, self.divisor).split(1, 1)
         log_width = width.clamp(min=LEAST_WIDTH).log()
         given = torch.cat([z, 2 * (z - before).abs(), 2 * steepness(z), log_width / 2 + 1.5, lung], 1)
-        ratio = self.leave(silu(self.join(torch.cat([self.unet(given), given], 1))))
+        ratio = slab_by_slab(self.unet, self._head, given)
         log_scale = (log_width - 0.8 + ratio.float()).clamp(*LOG_SCALE)
         x, y, z_size = seen.shape[2:]
         return log_scale[..., :x, :y, :z_size]
+
+    def _head(self, found: Tensor, given: Tensor) -> Tensor:
+        return self.leave(silu(self.join(torch.cat([found, given], 1))))
 
     def half_widths(self, seen: Tensor) -> Tensor:
         """Half-widths (B, len(LEVELS), X, Y, Z), in the prior's range, of the intervals around the CT."""

@@ -19,9 +19,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
+from phydict.runtime.memory import enough_memory
 from phydict.runtime.parser_message import plain
 from phydict.runtime.progress_log import log_always, log_problem, log_progress
-from phydict.runtime.reading import enough_memory, one_line
+from phydict.runtime.reading import one_line
 from phydict.runtime.warning import Remark
 
 NOISE = (".*does not have many workers", "Consider setting `persistent_workers", ".*LeafSpec.*is deprecated",

@@ -1,4 +1,4 @@
-"""Reading what users give: no more than a file holds or memory takes, and whatever is wrong with it in one sentence."""
+"""Reading what users give: no more than a file holds, and whatever is wrong with it in one sentence."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import errno
 import math
 import os
 import re
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,15 +17,6 @@ MOST_TEXT = 2**24
 
 MOST_SQUEEZED = 1100
 """Times by which a file shrinks at most when it is compressed: deflate, the best of those that are read, 1032."""
-
-CONTROL_GROUPS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-"""Where Linux says how much memory a container has, as a number of bytes or "max"."""
-
-USAGE = {"memory.max": "memory.current", "memory.limit_in_bytes": "memory.usage_in_bytes"}
-"""What of it is in use, by the file of the limit beside it."""
-
-MEMINFO, STATM = Path("/proc/meminfo"), Path("/proc/self/statm")
-"""Where Linux says how much memory is free, and how much of it this process holds."""
 
 MAX_MESSAGE = 800
 """Characters of a sentence about what cannot be read; it may quote a file."""
@@ -149,63 +139,3 @@ def check_held(promised: int, path: Path, what: str, times: int) -> None:
     if promised > times * (size := path.stat().st_size):
         raise ValueError(f"its header promises {promised:,} {what} but the file has {size:,} bytes: it is truncated or "
                          "damaged")
-
-
-class TooLittleMemory(ValueError):
-    """This machine has too little memory; a larger one could do it."""
-
-
-def check_memory(needed: int, what: str, advice: str, now: bool = False) -> None:
-    """Raises TooLittleMemory, with both numbers, where `what` takes more bytes than this machine, or the container
-    that this runs in, has memory; now: or, beside what this process holds, has free at present."""
-    there = min([_memory(), *container_limits().values()])
-    takes = f"{what} would take {needed / 2**30:,.1f} GiB of memory, but"
-    if needed > there:
-        raise TooLittleMemory(f"{takes} this machine has {there / 2**30:,.1f}; {advice}")
-    if now and (free := free_memory()) is not None and needed > free:
-        raise TooLittleMemory(f"{takes} of the {there / 2**30:,.1f} that this machine has other programs leave "
-                              f"{free / 2**30:,.1f} at present; end some of them, or {advice}")
-
-
-def _memory() -> float:
-    """Bytes of memory that this machine has; infinite on Windows, which is not asked."""
-    if sys.platform == "win32":
-        return math.inf
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def free_memory() -> int | None:
-    """Bytes of memory and swap that are free or that this process holds, in a container of what it may use; None where
-    the system does not say."""
-    if sys.platform == "win32":
-        return None
-    try:
-        kilobytes = dict(line.split()[:2] for line in MEMINFO.read_text().splitlines())
-        own = int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        free = [1024 * (int(kilobytes["MemAvailable:"]) + int(kilobytes.get("SwapFree:", 0)))]
-        for path, limit in container_limits().items():
-            stat = dict(line.split() for line in path.with_name("memory.stat").read_text().splitlines())
-            files = sum(int(stat.get(f"total_{kind}", stat.get(kind, 0))) for kind in ("inactive_file", "active_file"))
-            free.append(limit - int(path.with_name(USAGE[path.name]).read_text()) + files)  # which give way
-    except (OSError, KeyError, ValueError):
-        return None
-    return min(free) + own
-
-
-@contextmanager
-def enough_memory() -> Iterator[None]:
-    """Raises TooLittleMemory where main memory or a device's gives out inside."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        device = type(error).__name__ == "OutOfMemoryError"  # torch's, which takes long to import
-        if not (device or isinstance(error, MemoryError) or "can't allocate memory" in str(error)):
-            raise
-        raise TooLittleMemory(f"memory gave out ({one_line(str(error)) or 'MemoryError'}): give fewer voxels, fewer "
-                              "samples or a smaller batch, or use a machine with more") from error
-
-
-def container_limits() -> dict[Path, int]:
-    """Bytes of memory that control groups of either version allow, where they say so, by the file that does."""
-    texts = {path: path.read_text().strip() for path in CONTROL_GROUPS if os.access(path, os.R_OK)}
-    return {path: int(text) for path, text in texts.items() if text.isdigit()}

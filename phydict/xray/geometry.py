@@ -14,7 +14,8 @@ import yaml
 
 from phydict.grid import Grid, whole_sizes
 from phydict.runtime.files import atomic_write
-from phydict.runtime.reading import check_memory, naming
+from phydict.runtime.memory import check_memory
+from phydict.runtime.reading import naming
 from phydict.runtime.yaml_file import read_yaml
 from phydict.xray.orbits import on_circle, on_line, turned
 from phydict.xray.stated import (

@@ -32,8 +32,8 @@ from phydict.methods import METHODS
 from phydict.prior import save_prior
 from phydict.runtime import profiling
 from phydict.runtime.files import alone_in, machine
+from phydict.runtime.memory import TooLittleMemory
 from phydict.runtime.profiling import profiled
-from phydict.runtime.reading import TooLittleMemory
 from phydict.units import HUWindow
 from phydict.xray import ConeBeam, Projector
 

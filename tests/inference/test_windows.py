@@ -14,8 +14,8 @@ import pytest
 from inference.runs import names, record, sirt, volume
 from phydict.cli.infer import main
 from phydict.datasets.cts import preparation
-from phydict.runtime import console, files, profiling, reading
-from phydict.runtime.reading import check_memory, free_memory
+from phydict.runtime import console, files, memory, profiling
+from phydict.runtime.memory import check_memory, free_memory
 
 LACKING = ((files, "fcntl"), (profiling, "resource"), (os, "register_at_fork"), (os, "sysconf"), (select, "poll"),
            (signal, "pthread_sigmask"), (signal, "pthread_kill"))
@@ -33,7 +33,7 @@ class WindowsSys:
 @pytest.fixture
 def on_windows(monkeypatch, tmp_path):
     """Takes away what Windows has not got."""
-    for module in (files, profiling, reading, console, preparation):
+    for module in (files, profiling, memory, console, preparation):
         monkeypatch.setattr(module, "sys", WindowsSys())
     for module, name in LACKING:
         monkeypatch.delattr(module, name)
@@ -51,7 +51,7 @@ def on_windows(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "open", opened)
     monkeypatch.setattr(os, "kill", sent)
     for name in ("MEMINFO", "STATM"):
-        monkeypatch.setattr(f"phydict.runtime.reading.{name}", tmp_path / "none")
+        monkeypatch.setattr(f"phydict.runtime.memory.{name}", tmp_path / "none")
     monkeypatch.setattr(profiling, "Path", lambda file: tmp_path / "none" / file.lstrip("/"))
 
 

@@ -18,7 +18,7 @@ from phydict.methods import onto_grid, reconstruct, reconstructor
 from phydict.posterior import Measurement, Posterior, PriorOnly, ProximalCG, Refined, Refinement, Unrolled
 from phydict.prior import CorrectionNetwork
 from phydict.prior.uncertainty import LEVELS
-from phydict.runtime.reading import check_memory, free_memory
+from phydict.runtime.memory import check_memory, free_memory
 from phydict.units import HUWindow, hu_to_mu
 from phydict.xray import ConeBeam, Projector
 from phydict.xray.calibration import without_hardening
@@ -430,7 +430,7 @@ def test_more_voxels_than_memory_are_refused_with_their_gib_before_work_starts(x
 @pytest.mark.parametrize("limit", [f"{2**30}\n", "max\n"])
 def test_a_container_has_the_memory_that_it_may_use(tmp_path, monkeypatch, limit):
     (tmp_path / "memory.max").write_text(limit)
-    monkeypatch.setattr("phydict.runtime.reading.CONTROL_GROUPS", (tmp_path / "memory.max", tmp_path / "not there"))
+    monkeypatch.setattr("phydict.runtime.memory.CONTROL_GROUPS", (tmp_path / "memory.max", tmp_path / "not there"))
     monkeypatch.setattr("os.sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**19}.__getitem__)  # 2 GiB
     has = "2.0" if limit == "max\n" else "1.0"
     check_memory(2**30 - 1, "it", "take less")
@@ -443,7 +443,7 @@ def meminfo(folder, monkeypatch, gib: float) -> None:
     (folder / "meminfo").write_text(f"MemTotal: 8388608 kB\nMemAvailable: {gib * 2**20:.0f} kB\nSwapFree: 1024 kB\n")
     (folder / "statm").write_text(f"1 {2**30 // os.sysconf('SC_PAGE_SIZE')} 0\n")
     for name in ("MEMINFO", "STATM"):
-        monkeypatch.setattr(f"phydict.runtime.reading.{name}", folder / name.lower())
+        monkeypatch.setattr(f"phydict.runtime.memory.{name}", folder / name.lower())
 
 
 def test_voxels_for_which_other_programs_leave_too_little_memory_are_refused_before_work_starts(
@@ -464,7 +464,7 @@ def test_voxels_for_which_other_programs_leave_too_little_memory_are_refused_bef
 def test_of_a_containers_memory_what_it_uses_is_not_free_but_files_that_give_way(
         tmp_path, monkeypatch, limit, usage, files):
     meminfo(tmp_path, monkeypatch, 6.0)
-    monkeypatch.setattr("phydict.runtime.reading.CONTROL_GROUPS", (tmp_path / limit,))
+    monkeypatch.setattr("phydict.runtime.memory.CONTROL_GROUPS", (tmp_path / limit,))
     for name, text in ((limit, 4 * 2**30), (usage, 3 * 2**30),
                        ("memory.stat", f"anon 5\n{files.format('in')} {2**28}\n{files.format('')} {2**28}")):
         (tmp_path / name).write_text(f"{text}\n")

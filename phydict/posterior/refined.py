@@ -42,7 +42,7 @@ ON_FINER = {0.5: (0.85, 0.0), 0.8: (1.0, 0.0), 0.9: (1.0, 0.1), 0.95: (1.0, 0.2)
 two CTs kept from training these hold 43 to 52, 75 to 86, 85 to 95 and 92 to 99 % of the body from 1 to 16 views. Those
 of other levels are interpolated, and beyond the ends they are those there."""
 
-CORRECTED_VOLUMES = 55
+CORRECTED_VOLUMES = 62
 """Volumes of the finest voxels that a refinement by a network on them holds at most, in float32
 (tests/benchmark/grid_cost.csv)."""
 

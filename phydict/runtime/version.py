@@ -1,3 +1,3 @@
 """Which version this is."""
 
-VERSION = "0.7.17"
+VERSION = "0.7.18"

@@ -263,13 +263,15 @@ def test_neither_picture_engine_nor_cache_that_cannot_be_keeps_a_command_from_st
     assert run.returncode == 0 and run.stdout.lower().strip() == "agg", run.stderr
 
 
-@pytest.mark.parametrize("own, spins", [
-    ({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "")])
-def test_threads_spin_shortly_for_each_other_unless_the_environment_says_how(own, spins):
+@pytest.mark.parametrize("own, spins, script", [
+    ({}, "3000", "phydict/__init__.py"), ({"GOMP_SPINCOUNT": "7"}, "7", "phydict/__init__.py"),
+    ({"OMP_WAIT_POLICY": "active"}, "", "phydict/__init__.py"),
+    ({}, "3000", "data/example/demo.py"), ({}, "3000", "data/example/walkthrough.py")])
+def test_threads_spin_shortly_for_each_other_unless_the_environment_says_how(own, spins, script):
     """Which is settled before torch is loaded."""
     left = {name: value for name, value in os.environ.items() if name not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
-    run = subprocess.run([sys.executable, "-c", "import contextlib, os, sys; sys.modules['torch'] = None\n"
-                          "with contextlib.suppress(ImportError): import phydict\n"
+    run = subprocess.run([sys.executable, "-c", "import contextlib, os, runpy, sys; sys.modules['torch'] = None\n"
+                          f"with contextlib.suppress(ImportError): runpy.run_path({script!r})\n"
                           "print(os.environ.get('GOMP_SPINCOUNT', ''))"],
                          cwd=ROOT, capture_output=True, text=True, env=left | own)
     assert run.stdout.strip() == spins, run.stderr

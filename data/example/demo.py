@@ -5,12 +5,14 @@
 
 from pathlib import Path
 
+import phydict  # before torch: beside another program torch's threads then wait less for each other
+
+# isort: split
 import nibabel
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-import phydict
 from phydict.datasets import body_mask, load_xrays
 from phydict.evaluation import mean_table, method_panel, panel, volume_metrics, write_csv
 from phydict.inference.case_files import write_page_files

@@ -6,11 +6,13 @@
 import sys
 from pathlib import Path
 
+import phydict  # before torch: beside another program torch's threads then wait less for each other
+
+# isort: split
 import nibabel
 import numpy as np
 import torch
 
-import phydict
 from phydict.evaluation import method_panel, panel, volume_metrics
 
 METHODS = ("sirt", "phydict_learned")

@@ -16,9 +16,10 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
                         reorthogonalise: bool = False) -> Tensor:
     """d with operator(d) = right (B, ...), from zero (Hestenes & Stiefel 1952, doi:10.6028/jres.049.044).
 
-    iterations: at most; a case is left alone once its residual has shrunk by `tolerance`. Where the operator is
-    singular and `right` in its range, this is the solution of least norm. preconditioner: diagonal of an approximate
-    inverse; where it is 0, d stays 0. on_step: called `iterations` times, as each is done or found needless.
+    iterations: at most; a case is left alone once its residual has shrunk by `tolerance`, or to what rounding leaves,
+    from where on nothing is gained and kept residuals are no longer orthogonal. Where the operator is singular and
+    `right` in its range, this is the solution of least norm. preconditioner: diagonal of an approximate inverse; where
+    it is 0, d stays 0. on_step: called `iterations` times, as each is done or found needless.
     reorthogonalise: each residual is made orthogonal again to all before it, which in single precision it no longer is
     after a dozen iterations, so that what more of them give turns on the last digit (Golub & Van Loan, Matrix
     Computations, 10.3); takes the memory of up to two right sides for each iteration that is done.
@@ -27,7 +28,7 @@ def conjugate_gradients(operator: Callable[[Tensor], Tensor], right: Tensor, ite
     residual, d = right.clone(), torch.zeros_like(right)
     direction = preconditioner * residual
     energy = (residual * direction).sum(over, keepdim=True)
-    stop = energy * tolerance**2
+    stop = energy * max(tolerance, torch.finfo(right.dtype).eps) ** 2
     kept = right.new_empty(min(iterations, KEPT), len(right), right[0].numel()) if reorthogonalise else None
     for n in range(iterations):
         if (energy > stop).any():

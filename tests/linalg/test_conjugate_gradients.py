@@ -61,3 +61,12 @@ def test_the_most_residuals_that_are_held_are_both_rooms_while_the_second_is_mad
     monkeypatch.setattr(torch, "cat", lambda parts: held.append(2 * sum(map(len, parts))) or cat(parts))
     solved(torch.float32, iterations, True)
     assert max(held) == most_kept(iterations) and (len(held) > 1) == doubled
+
+
+def test_iterations_beyond_the_solution_change_nothing_without_a_tolerance():
+    """Of six unknowns more than twelve kept residuals had made each further one larger, without an end."""
+    rows = random_like((3, 6), seed=4)
+    matrix = rows.T @ rows + 0.01 * torch.eye(6).double()
+    right = random_like((1, 6), seed=5)
+    found = conjugate_gradients(lambda d: d @ matrix, right, 400, 0.0, reorthogonalise=True)
+    torch.testing.assert_close(found[0], torch.linalg.solve(matrix, right[0]), rtol=1e-9, atol=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -23,7 +24,7 @@ from phydict.training import PriorTraining, SuperResolutionTraining
 from phydict.training.data import PriorData
 from phydict.training.refinement import RefinementTraining
 from phydict.training.refiner import RefinerTraining
-from phydict.training.settings import HoldOut, TextSettings
+from phydict.training.settings import HoldOut, Loading, TextSettings
 from phydict.training.stage import StageTraining
 
 
@@ -163,6 +164,33 @@ def test_as_many_cases_validate_as_are_asked_for_however_many_processes_share_th
     data = PriorData(phantoms=1, holdout=HoldOut(phantoms=3), cache=str(cache), cube=Cube(16))
     data.trainer = SimpleNamespace(limit_val_batches=limit)
     assert len(data.val_dataloader().dataset) == cases
+
+
+class Struck:
+    """Four cases, while each of which is made the process that makes it gets a signal."""
+
+    def __init__(self, number: int):
+        self.number = number
+
+    def __len__(self) -> int:
+        return 4
+
+    def __getitem__(self, index: int) -> int:
+        signal.raise_signal(self.number)
+        return index
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kind", ["train", "val"])
+def test_loaders_go_on_where_a_signal_strikes_every_process_of_a_training(monkeypatch, cache, kind, number):
+    data = PriorData(phantoms=1, holdout=HoldOut(phantoms=1), cache=str(cache), cube=Cube(16),
+                     loading=Loading(batch_size=1, epoch_size=4, workers=1))
+    progress = SimpleNamespace(epoch_progress=SimpleNamespace(current=None), restarting=False)
+    data.trainer = SimpleNamespace(limit_val_batches=1.0, reload_dataloaders_every_n_epochs=1, current_epoch=0,
+                                   world_size=1, global_rank=0, fit_loop=progress)
+    for name, value in {"draws": lambda _: Struck(number), "validation": Struck(number), "collate": list}.items():
+        monkeypatch.setattr(data, name, value, raising=False)
+    assert list(getattr(data, f"{kind}_dataloader")()) == [[0], [1], [2], [3]]
 
 
 def test_weights_are_shared_out_to_as_many_devices_as_there_are(tmp_path, cache, capsys):

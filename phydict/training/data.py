@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property
@@ -195,7 +196,7 @@ class PriorData(lightning.LightningDataModule):
         turns: DistributedSampler = DistributedSampler(draws, self.trainer.world_size, self.trainer.global_rank,
                                                        shuffle=False, drop_last=True)
         return DataLoader(draws, self.loading.batch_size, sampler=turns, num_workers=self.loading.workers,
-                          drop_last=True, collate_fn=self.collate)
+                          drop_last=True, collate_fn=self.collate, worker_init_fn=leave_signals)
 
     def draws(self, epoch: int) -> Dataset:
         """What is trained on in an epoch."""
@@ -217,13 +218,21 @@ class PriorData(lightning.LightningDataModule):
         limit, cases = self.trainer.limit_val_batches, self.validation
         if isinstance(limit, int):  # which Lightning lets each process take
             cases = Subset(cases, range(min(limit, len(cases))))  # type: ignore[arg-type]
-        return DataLoader(cases, 1, num_workers=self.loading.workers, collate_fn=self.collate)
+        return DataLoader(cases, 1, num_workers=self.loading.workers, collate_fn=self.collate,
+                          worker_init_fn=leave_signals)
 
     def collate(self, cases: list[dict]) -> dict:
         """A batch of cases in the model's voxels; drawn in finer ones, these are the batch's "fine" volumes, and their
         means over blocks are what is learnt."""
         batch = torch.utils.data.default_collate([training_parts(case) for case in cases])
         return batch if self.factor == 1 else averaged(batch, self.factor) | {"fine": batch["volume"]}
+
+
+def leave_signals(worker: int) -> None:
+    """Has a loader process leave Ctrl-C and SIGTERM, which a terminal or a scheduler sends to every process of a
+    training, to the one that trains: it ends the loaders when it ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _held_out(files: list[CTFile], holdout: HoldOut, seed: int) -> list[CTFile]:

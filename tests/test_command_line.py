@@ -51,6 +51,24 @@ def test_memory_that_gives_out_is_one_sentence(take, words, capsys):
     assert words in said and "give fewer voxels" in said
 
 
+class Wide(torch.utils.data.Dataset):
+    """One case of more than any machine's shared memory."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> torch.Tensor:
+        return torch.ones(1).expand(2**45)
+
+
+def test_shared_memory_that_gives_out_is_one_sentence(capsys):
+    with pytest.raises(SystemExit) as stopped, cli_errors():
+        next(iter(torch.utils.data.DataLoader(Wide(), num_workers=1)))
+    said = capsys.readouterr().err
+    assert stopped.value.code == 2 and said.count("\n") == 1 and said.startswith("error: the processes that load data ")
+    assert "shared memory" in said and "--shm-size" in said and "data.loading.workers" in said
+
+
 def test_other_errors_of_torch_show_where_they_arise(capsys):
     with pytest.raises(RuntimeError, match="must match the size") as error, cli_errors():
         torch.zeros(2) + torch.zeros(3)

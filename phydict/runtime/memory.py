@@ -10,6 +10,7 @@ import ctypes
 import math
 import os
 import platform
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,6 +38,10 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 OWN_CHOICE = "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_MAX_", "GLIBC_TUNABLES"
 """Environment variables by which a user has settled it."""
+
+LOADERS = re.compile("unable to allocate shared memory|DataLoader worker .* is killed by signal: (Bus error|Killed)")
+"""What torch says where processes that load data lack memory, their own or what they share, of which Docker gives a
+container 64 MiB."""
 
 _inside, _counting = 0, Lock()
 
@@ -84,10 +89,14 @@ def free_memory() -> int | None:
 
 @contextmanager
 def enough_memory() -> Iterator[None]:
-    """Raises TooLittleMemory where main memory or a device's gives out inside."""
+    """Raises TooLittleMemory where main memory, a device's or what processes share gives out inside."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
+        if LOADERS.search(text := str(error)):
+            raise TooLittleMemory(f"the processes that load data lack memory ({one_line(text.splitlines()[-1])}): "
+                                  "give the container more in /dev/shm, as docker run --shm-size does, fewer "
+                                  "data.loading.workers, or 0, or a smaller batch") from error
         device = type(error).__name__ == "OutOfMemoryError"  # torch's, which takes long to import
         if not (device or isinstance(error, MemoryError) or "can't allocate memory" in str(error)):
             raise

@@ -69,6 +69,17 @@ def test_shared_memory_that_gives_out_is_one_sentence(capsys):
     assert "shared memory" in said and "--shm-size" in said and "data.loading.workers" in said
 
 
+def test_what_is_closed_before_the_start_is_not_written_to(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", None)
+    with cli_errors():
+        print("volume")
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "stderr", None)
+    with pytest.raises(SystemExit) as stopped, cli_errors():
+        raise ValueError("what was wrong")
+    assert stopped.value.code == 2 and capsys.readouterr().out == ""
+
+
 def test_other_errors_of_torch_show_where_they_arise(capsys):
     with pytest.raises(RuntimeError, match="must match the size") as error, cli_errors():
         torch.zeros(2) + torch.zeros(3)

@@ -55,7 +55,8 @@ def cli_errors(*also: type[Exception]) -> Iterator[None]:
     try:
         with _raised_again(), enough_memory():
             yield
-            sys.stdout.flush()
+            if sys.stdout is not None:  # closed before the start, as some daemons have it
+                sys.stdout.flush()
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning exits with 1 on SIGINT and without a code on SIGTERM
         interrupted = isinstance(stop, KeyboardInterrupt) or isinstance(stop.__context__, KeyboardInterrupt)
         if not interrupted and isinstance(stop, SystemExit) and stop.code is not None:

@@ -60,6 +60,8 @@ def log_progress(text: str, /, **event: object) -> None:
 
 def log_always(text: str, /, **event: object) -> None:
     """As `log_progress`, but never silenced."""
+    if sys.stderr is None:  # closed before the start: `print` would write to standard output
+        return
     print(strict_json(event) if _MANNER.get() == JSON else text, file=sys.stderr, flush=True)
 
 

@@ -295,7 +295,8 @@ def test_neither_picture_engine_nor_cache_that_cannot_be_keeps_a_command_from_st
 @pytest.mark.parametrize("own, spins, script", [
     ({}, "3000", "phydict/__init__.py"), ({"GOMP_SPINCOUNT": "7"}, "7", "phydict/__init__.py"),
     ({"OMP_WAIT_POLICY": "active"}, "", "phydict/__init__.py"),
-    ({}, "3000", "data/example/demo.py"), ({}, "3000", "data/example/walkthrough.py")])
+    ({}, "3000", "data/example/demo.py"), ({}, "3000", "data/example/walkthrough.py"),
+    ({}, "3000", "data/example/make.py"), ({}, "3000", "data/example/own_volumes/simulate.py")])
 def test_threads_spin_shortly_for_each_other_unless_the_environment_says_how(own, spins, script):
     """Which is settled before torch is loaded."""
     left = {name: value for name, value in os.environ.items() if name not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}

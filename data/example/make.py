@@ -5,9 +5,11 @@
 
 from pathlib import Path
 
+from phydict import ConeBeam, Grid, HUWindow, Projector  # before torch, so that threads wait less
+
+# isort: split
 import torch
 
-from phydict import ConeBeam, Grid, HUWindow, Projector
 from phydict.datasets import phantom_case, save_xrays
 from phydict.reconstruction import save_nifti
 from phydict.xray import Ideal

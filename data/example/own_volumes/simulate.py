@@ -6,9 +6,11 @@
 import argparse
 from pathlib import Path
 
+from phydict import Grid, HUWindow, case_seed  # before torch, so that threads wait less
+
+# isort: split
 import torch
 
-from phydict import Grid, HUWindow, case_seed
 from phydict.datasets import save_xrays
 from phydict.inference.data import ReconstructionData
 from phydict.inference.settings import Orbit

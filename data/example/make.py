@@ -5,7 +5,7 @@
 
 from pathlib import Path
 
-from phydict import ConeBeam, Grid, HUWindow, Projector  # before torch, so that threads wait less
+from phydict import ConeBeam, Grid, HUWindow, Projector  # before torch, whose threads then wait less beside others
 
 # isort: split
 import torch

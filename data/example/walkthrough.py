@@ -6,7 +6,7 @@
 import sys
 from pathlib import Path
 
-import phydict  # before torch: beside another program torch's threads then wait less for each other
+import phydict  # before torch, whose threads then wait less beside others
 
 # isort: split
 import nibabel

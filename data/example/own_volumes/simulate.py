@@ -6,7 +6,7 @@
 import argparse
 from pathlib import Path
 
-from phydict import Grid, HUWindow, case_seed  # before torch, so that threads wait less
+from phydict import Grid, HUWindow, case_seed  # before torch, whose threads then wait less beside others
 
 # isort: split
 import torch
